@@ -94,6 +94,9 @@ def test_ppo_is_ahead_of_the_best_rules_in_two_tasks_and_behind_in_three() -> No
     assert {name for name, each in found.items() if each.low > 0} == {"bottleneck", "path_follow"}
     assert {name for name, each in found.items() if each.high < 0} == {"corridor", "flock", "obstacles"}
     assert found.keys() == TASKS.keys()
+    tasks = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))["tasks"]
+    ppo, rules = (tasks["bottleneck"]["players"][name]["success_rate"] for name in ("ppo", "rules"))
+    assert f"fewer worlds ({100 * ppo:.0f} % against {100 * rules:.0f} %)" in README
     text = README.split("and level in ")[1].split(".")[0]
     level = re.sub(r"\(ORCA\)|,| and", " ", text).split()
     assert sorted(level) == sorted(name for name, each in found.items() if is_level(each))

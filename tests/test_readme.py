@@ -22,7 +22,9 @@ def test_the_example_runs_and_the_hand_written_player_scores_well(capsys: pytest
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(code.strip().splitlines()) <= 12
     exec(compile(code, "README.md", "exec"), {})  # noqa: S102  # the example of the README
-    mean, _ = (float(x) for x in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)[:2])
+    mean, deviation = (float(x) for x in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)[:2])
+    said = re.findall(r"rounded `\(([\d.]+), ([\d.]+)\)`", README)
+    assert [tuple(map(float, pair)) for pair in said] == [pytest.approx((mean, deviation), abs=0.05)]
     assert mean > 5, "the hand-written pursuer catches nearly all: 10 for a capture, minus half a point per second"
 
 

@@ -6,8 +6,10 @@ import importlib.util
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from flockenv.scene.yaml_io import load_scene
 from tests.page_scripts import ROOT, numbers, run_page
 
 pytestmark = pytest.mark.slow
@@ -42,6 +44,11 @@ def test_birds_of_the_page_agree_on_a_direction_only_with_alignment(tmp_path: Pa
     printed, lines = played("tutorials/own_scene", tmp_path)
     aligned, without = map(float, lines)
     assert aligned > 0.8 > 0.5 > without
+    flock = load_scene(tmp_path / "flock.yaml")
+    speeds = [np.linalg.norm(scene.run(scene.start(0), 600).vel[0], axis=1).mean() for scene in (
+        flock, flock.with_effects(*(each for each in flock.effects if each.kind != "target_speed")),
+    )]  # fmt: skip
+    assert speeds == [pytest.approx(2.5, abs=0.2), pytest.approx(0.24, abs=0.05)]  # m/s
     assert any("polarisation" in line for line in printed)
     assert (tmp_path / "flock.gif").stat().st_size > 1000
 
@@ -55,7 +62,10 @@ def test_the_trained_policy_of_the_page_plays_and_is_compared(tmp_path: Path) ->
     scores = {line.split(":")[0]: numbers(line)[0] for line in lines[:3]}
     assert scores["rules"] > 5
     assert scores["rules"] > scores["mine"] > scores["random"]
-    assert "worlds=32" in lines[3]
+    assert lines[3].startswith("mine - rules: ")
+    lead, _, low, high, worlds = numbers(lines[3].partition(":")[2].replace("95 %", "95"))
+    assert low <= lead <= high and worlds == 32
+    assert lead == pytest.approx(scores["mine"] - scores["rules"], abs=0.02)
 
 
 def test_the_study_of_the_page_has_a_line_for_its_setting(tmp_path: Path) -> None:
