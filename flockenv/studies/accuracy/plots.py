@@ -40,7 +40,7 @@ def draw_precision(reports: Sequence[Report]) -> Figure:
     """Return the picture: per problem errors at the end against wall time, below them against force evaluations.
 
     The number at the end of a line is the measured order; grey slopes show what orders 1, 2 and 4 would look
-    like. Hollow points are not clearly above the reference's own error, whose size is below the title; the grey band
+    like. Hollow points are not clearly above the reference's own error, whose size is below the title; the shaded band
     begins where errors are not trusted. The legend of a single problem also has the orders.
 
     Raises:
@@ -212,5 +212,5 @@ def _note_text(reports: Sequence[Report]) -> str:
     times = f"median of {first.repetitions} runs" if first.repetitions else "no times taken"
     return (
         f"{first.machine.cpu}{load}; {times}; {first.dtype}. Number at a line's end: measured order.\n"
-        "Grey band and hollow points: not clearly above rounding and the reference's own error."
+        "Shaded band and hollow points: not clearly above rounding and the reference's own error."
     )
