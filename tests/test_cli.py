@@ -546,7 +546,7 @@ def test_explain_prints_what_effects_need_and_what_is_not_computed(capsys: pytes
     assert "pass over obstacles (0): no effect needs them" in drag
     assert f"effects that are not listed: {', '.join(sorted(EFFECTS.keys() - {'drag'}))}" in " ".join(drag.split())
     assert "Largest stable step: 4 s (drag, agent 0), dt = 0.01 s" in drag  # |1 - h c / m| = 1
-    assert "Largest stable step: nothing in it sets a limit, unless agents that meet do; dt = 0.01 s" in flock
+    assert "Largest stable step: no effect limits dt; contacts between agents may; dt = 0.01 s" in flock
 
 
 def test_explain_names_the_effect_and_agent_that_limit_the_step() -> None:
@@ -557,6 +557,7 @@ def test_explain_names_the_effect_and_agent_that_limit_the_step() -> None:
     scene = Scene(groups=(Group(network=rope),), effects=(Springs(stiffness=100),), dt=0.02)
     # three free particles between two springs: w^2 <= 2 (100 + 100) N/m / kg, and h w = 2 at the most
     assert limit(scene) == "0.1 s (springs, agent 1), dt = 0.02 s"
+    assert limit(scene.with_effects()) == "no effect limits dt; contacts between agents may; dt = 0.02 s"
     assert limit(scene.model_copy(update={"integrator": ImplicitEuler()})) == (
         "any is stable with implicit_euler, dt = 0.02 s"
     )

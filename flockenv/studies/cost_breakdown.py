@@ -111,7 +111,7 @@ class Explanation:
             return f"{found.dt:.3g} s ({found.effect}, agent {found.agent}), {chosen}"
         if found.frequency or found.damping:
             return f"any is stable with {self.scene.integrator.kind}, {chosen}"
-        return f"nothing in it sets a limit, unless agents that meet do; {chosen}"
+        return f"no effect limits dt; contacts between agents may; {chosen}"
 
 
 def explain(
