@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,11 @@ from flockenv.behaviours import Separation
 from flockenv.core.warnings import UnstableStepWarning
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Jelly, Mesh, Network, Rope
+from flockenv.model.scene_view import SceneView
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import blank
 from flockenv.physics.effects import AngularSprings, Drag, Effect, Elastic, Gravity, Springs, Tether
+from flockenv.physics.integrators import INTEGRATORS as REGISTERED
 from flockenv.physics.integrators import (
     RK4,
     AdaptiveRK4,
@@ -387,6 +390,60 @@ def test_a_warning_names_the_step_method_effect_agent_and_limit() -> None:
     assert "another integrator" not in text
     assert "\n" not in text
     body(*effects, dt=0.19)  # a warning would be an error
+
+
+BLOCK = Jelly(cells=(2, 2), sides=(1, 1))
+SEMI, LINEARLY, FULLY = (
+    f", or integrator: {{kind: {kind}}}"
+    for kind in ("semi_implicit_euler", "linearly_implicit_euler", "implicit_euler")
+)
+COSTS = " (stable at any dt, but a step costs more)"
+STIFF = Springs(stiffness=4e7)  # stable up to 2.357e-5 s: the advice must not be rounded up
+
+
+class OnlyExplicit(Gravity):
+    """An effect that no implicit method accepts."""
+
+    def check(self, scene: SceneView) -> None:
+        """Raise ValueError for an implicit method."""
+        if scene.integrator.solves:
+            raise ValueError("kind: needs an explicit method")
+
+
+@pytest.mark.parametrize(
+    ("net", "effects", "method", "alternative"),
+    [
+        pytest.param(SHEET, (STIFF,), SemiImplicitEuler(), LINEARLY, id="springs"),
+        pytest.param(SHEET, (STIFF,), VelocityVerlet(), LINEARLY, id="verlet"),
+        pytest.param(BLOCK, (Elastic(young=1e9),), SemiImplicitEuler(), FULLY + COSTS, id="elastic"),
+        pytest.param(BLOCK, (Elastic(young=1e9), Springs(stiffness=1)), RK4(), FULLY + COSTS, id="elastic and springs"),
+        pytest.param(SHEET, (Springs(stiffness=1, damping=1e-5),), ExplicitEuler(), SEMI, id="explicit"),
+        pytest.param(SHEET, (STIFF, OnlyExplicit(acceleration=(0, 0))), SemiImplicitEuler(), "", id="refused"),
+    ],
+)
+def test_where_dt_is_far_too_long_a_dt_and_a_method_are_recommended_that_work(
+    net: Network, effects: tuple[Effect, ...], method: Integrator, alternative: str
+) -> None:
+    """With either there is no warning, and some steps are finite."""
+    text = _advice(net, effects, method)
+    found = re.search(r"so take dt <= (\S+) s(.*)$", text)
+    assert found is not None, text
+    assert found[2] == alternative
+    network(net, *effects, method=method, dt=float(found[1]))  # a warning would be an error
+    if kind := re.search(r"kind: (\w+)", alternative):
+        other = network(net, *effects, method=REGISTERED[kind[1]](), dt=0.02)
+        assert np.isfinite(other.run(other.start(0), 3).pos).all()
+
+
+def _advice(net: Network, effects: tuple[Effect, ...], method: Integrator) -> str:
+    """Return the text with which a scene of dt = 0.02 s warns or is refused."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            network(net, *effects, method=method, dt=0.02)
+        except ValueError as error:
+            return str(error)
+    return str(caught[0].message)
 
 
 @pytest.mark.parametrize("method", [ExplicitEuler(), AveragedVelocity(), Midpoint(), Heun()], ids=lambda m: m.kind)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
@@ -113,6 +113,9 @@ class SceneView(Protocol):
     @property
     def table(self) -> Any:
         """The bonds of all effects."""
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None) -> SceneView:
+        """Return a copy with the fields in `update` changed, validated as a new scene."""
 
     def table_of(self, effect: Any) -> NDArray[Any]:
         """Return the table that the laws of an effect read."""

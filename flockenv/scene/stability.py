@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from flockenv.core.warnings import CoarseContactWarning, LookaheadWarning, UnstableStepWarning
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import blank
-from flockenv.physics.integrators.integrator import Integrator
+from flockenv.physics.integrators import ImplicitEuler, Integrator, LinearlyImplicitEuler, SemiImplicitEuler
 
 if TYPE_CHECKING:
     from flockenv.model.group import Group
@@ -59,6 +59,9 @@ WEAK = 0.1
 
 STEADY = "semi_implicit_euler, velocity_verlet or rk4"
 """Methods with stable steps for undamped oscillations."""
+
+ALTERNATIVES: tuple[Integrator, ...] = (SemiImplicitEuler(), LinearlyImplicitEuler(), ImplicitEuler())
+"""Methods that are recommended where another one needs tiny steps, the cheapest first."""
 
 SMALLEST, LARGEST, POINTS = 1e-7, 1e3, 300  # h w that are tested
 ROUNDS = 3  # of refining the limit
@@ -183,19 +186,19 @@ def suggest_dt(scene: SceneView) -> Suggestion:
     that needs damping to be stable (explicit Euler, Heun, midpoint), less damped motions may be unstable, such as
     springs across their length.
     """
-    return _suggest(scene, _effect_rates(scene))
+    return _suggest(scene, _effect_rates(scene, scene.integrator), scene.integrator)
 
 
-def _suggest(scene: SceneView, rates_of_effects: list[tuple[Effect, _Rates]]) -> Suggestion:
-    """Return the largest stable step under some effects of a scene."""
+def _suggest(scene: SceneView, rates_of_effects: list[tuple[Effect, _Rates]], method: Integrator) -> Suggestion:
+    """Return the largest stable step of a method under some effects of a scene."""
     if not rates_of_effects:
         return Suggestion(math.inf, None, None, 0.0, 0.0)
     total = _Rates(*(sum(rates[k] for _, rates in rates_of_effects) + np.zeros(scene.agents) for k in range(3)))
-    dt, agent = _smallest_limit(scene.integrator, total)
+    dt, agent = _smallest_limit(method, total)
     if not math.isfinite(dt):
         most = (float(np.sqrt(total.square.max())), float((total.damping + total.drag).max()))
         return Suggestion(math.inf, None, None, *most)
-    alone = [(*_urgency(scene.integrator, *rates.of(agent)), effect.kind) for effect, rates in rates_of_effects]
+    alone = [(*_urgency(method, *rates.of(agent)), effect.kind) for effect, rates in rates_of_effects]
     square, damping, drag = total.of(agent)
     return Suggestion(dt, min(alone)[-1], agent, math.sqrt(square), damping + drag)
 
@@ -205,11 +208,11 @@ def _urgency(method: Integrator, square: float, damping: float, drag: float) -> 
     return _stable_step(method, square, damping, drag), -max(math.sqrt(square), damping + drag)
 
 
-def _effect_rates(scene: SceneView) -> list[tuple[Effect, _Rates]]:
-    """Return the effects with a known stiffness that the method takes explicitly, and their rates."""
+def _effect_rates(scene: SceneView, method: Integrator) -> list[tuple[Effect, _Rates]]:
+    """Return the effects with a known stiffness that a method takes explicitly, and their rates."""
     out = []
     for k, effect in enumerate(scene.effects):
-        if scene.integrator.linearises and effect.derivative is not None:
+        if method.linearises and effect.derivative is not None:
             continue
         acting = effect if scene.obstacles else effect.without_obstacles()
         try:
@@ -219,7 +222,7 @@ def _effect_rates(scene: SceneView) -> list[tuple[Effect, _Rates]]:
         if found is not None:
             square, damping = found
             zeros = np.zeros(len(damping))
-            separate = scene.integrator.splits_drag and effect.linear_drag is not None
+            separate = method.splits_drag and effect.linear_drag is not None
             out.append((effect, _Rates(square, zeros, damping) if separate else _Rates(square, damping, zeros)))
     return out
 
@@ -257,7 +260,8 @@ def check_dt(scene: SceneView) -> None:
     suggestion = suggest_dt(scene)
     if scene.dt <= suggestion.dt:
         return
-    always = _suggest(scene, [(effect, rates) for effect, rates in _effect_rates(scene) if effect.always])
+    method = scene.integrator
+    always = _suggest(scene, [found for found in _effect_rates(scene, method) if found[0].always], method)
     if scene.dt > CERTAIN * always.dt and _blows_up(scene, always):
         raise ValueError(_limit_message(scene, always))
     warnings.warn(_limit_message(scene, suggestion), UnstableStepWarning, stacklevel=2)
@@ -273,10 +277,36 @@ def _limit_message(scene: SceneView, suggestion: Suggestion) -> str:
             f"{_growth_time(scene, suggestion):.3g} s), so take another integrator ({STEADY}), or add damping"
         )
     elif suggestion.dt * max(suggestion.frequency, suggestion.damping) < WEAK or suggestion.dt < 1e-2 * scene.dt:
-        limit_text = f"at most {suggestion.dt:.3g} s is stable, so take another integrator"
+        most = _rounded_down(suggestion.dt)
+        limit_text = f"at most {most} s is stable, so take dt <= {most} s{_stable_alternative(scene)}"
     else:
         limit_text = f"at most {suggestion.dt:.4g} s is stable"
     return f"dt = {scene.dt:g} s: {kind} with {suggestion.effect} ({text}): {limit_text}"
+
+
+def _rounded_down(seconds: float) -> str:
+    """Return a time with three digits, not above its value: advice that is followed must not warn again."""
+    nearest = f"{seconds:.3g}"
+    return nearest if float(nearest) <= seconds else f"{seconds * 0.995:.3g}"
+
+
+def _stable_alternative(scene: SceneView) -> str:
+    """Return ", or integrator: {...}" with the cheapest method that is stable and accepted at the scene's dt, or ""."""
+    for method in ALTERNATIVES:
+        if scene.dt <= _suggest(scene, _effect_rates(scene, method), method).dt and _is_accepted(scene, method):
+            costs = " (stable at any dt, but a step costs more)" * method.stable_at_any_step
+            return f", or integrator: {{kind: {method.kind}}}{costs}"
+    return ""
+
+
+def _is_accepted(scene: SceneView, method: Integrator) -> bool:
+    """Return True if the scene is valid with another method."""
+    with warnings.catch_warnings(action="ignore"):  # of contacts; the step itself is stable
+        try:
+            scene.model_copy(update={"integrator": method})
+        except ValueError:
+            return False
+    return True
 
 
 def _growth_time(scene: SceneView, suggestion: Suggestion) -> float:
@@ -345,7 +375,7 @@ def _describe_consequence(scene: SceneView, frequency: float, agent: int) -> str
     method, y = scene.integrator, scene.dt * frequency
     if method.adaptive:
         return ""
-    rates = [each.of(agent) for _, each in _effect_rates(scene)]
+    rates = [each.of(agent) for _, each in _effect_rates(scene, method)]
     damping, drag = sum(each[1] for each in rates), sum(each[2] for each in rates)
     most = _stable_step(method, frequency**2, damping, drag)
     back = float(growth(method, np.array([y]), 0.0)[0]) ** (math.pi / y)
