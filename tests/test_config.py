@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -312,6 +313,15 @@ def test_error_is_one_line_with_place_value_and_allowed_values(old: str, new: st
     message = refusal(GOOD.replace(old, new))
     assert message.startswith(expected)
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("effect", ["kind: pulsing_wind", "kind: steer, behaviours: [{kind: fly_by_night}]"])
+def test_an_unknown_word_out_of_many_gets_the_five_nearest_and_not_all(effect: str) -> None:
+    """The name of an own effect is near no kind, and all kinds are 1,000 characters."""
+    message = refusal(GOOD.replace("effects:\n", f"effects:\n  - {{{effect}}}\n"))
+    found = re.search(r"kind = '\w+': unknown; the nearest of (\d+): ((?:\w+, ){4}\w+)$", message)
+    assert found is not None, message
+    assert int(found[1]) > 30
 
 
 def test_billion_agents_are_refused_with_an_estimate_of_memory() -> None:

@@ -191,10 +191,7 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
         return f"unknown key{nearest(str(path[-1]), keys) or ';'} allowed here: {', '.join(keys) or 'no key'}"
     choices = _choices(path, detail, schema, data)
     if choices:
-        close = "" if kind in _MISSING else nearest(str(_value(detail)), choices)
-        start = "missing;" if kind in _MISSING else f"unknown{close or ';'}"
-        more = f" allowed: {', '.join(choices)}" if not close or len(choices) <= MANY else ""
-        return f"{start}{more}"
+        return f"missing; allowed: {', '.join(choices)}" if kind in _MISSING else _unknown(str(_value(detail)), choices)
     node = _schema_at(path, schema, data)
     allowed, about = _range(node), _one_line(node.get("description", ""))
     if kind in _MISSING:
@@ -202,6 +199,14 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
     else:
         reason = (f"must be {allowed}" if allowed else message) + _hint(detail["input"], kind)
     return f"{reason} ({about})" if about else reason
+
+
+def _unknown(word: str, choices: list[str]) -> str:
+    """Return that a word is none of the choices: its nearest, and all of them unless they are MANY."""
+    close = nearest(word, choices)
+    if len(choices) <= MANY:
+        return f"unknown{close or ';'} allowed: {', '.join(choices)}"
+    return f"unknown{close or nearest_few(word, choices)}"
 
 
 def _hint(value: object, kind: str) -> str:
