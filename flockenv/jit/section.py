@@ -27,6 +27,7 @@ from flockenv.jit import cpu
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.jit.checked_store import Store
 from flockenv.jit.decorators import FAST, IN_PYTHON, Vec, kernel, python_of
+from flockenv.jit.law_errors import explain_errors
 from flockenv.jit.lock import OneAtATime, require_cached
 from flockenv.jit.machine_code import MachineCode
 from flockenv.jit.pipeline import Whole
@@ -125,6 +126,7 @@ def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Ca
     compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
     lock = ensure_private(store.folder / "locks") / f"{name}.lock"
     compiled._cache = _LateBuilt(MachineCode(store, name), lock, compiled, make, plan)
+    compiled._compiler.compile = explain_errors(compiled._compiler.compile, plan)
     compiled.made_of = make, plan
     return compiled  # type: ignore[no-any-return]
 
