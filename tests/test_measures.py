@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
+from flockenv.model.networks import Cloth
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
 from flockenv.studies.measures import MEASURES, measure, nearest_distances, order, polarisation
@@ -87,6 +88,23 @@ def test_measures_of_agents_placed_by_hand() -> None:
         {"agents": 4, "speed": 5, "polarisation": 1, "nearest_neighbour": (0.9 + 0.9 + 7.6 + 7.6) / 4, "contacts": 3}
     )
     assert found.keys() == MEASURES.keys()
+
+
+def test_particles_of_networks_have_no_polarisation_and_their_overlaps_are_no_contacts() -> None:
+    """A net of particles of radius .3 m, .2 m apart, and two agents that touch: one of them is in the net."""
+    net = Cloth(cells=(2, 2), sides=(0.4, 0.4), origin=(0, 0))
+    loose = Group(count=2, radius=0.3, spawn=Spawn(low=(0, 0), high=(1, 1)))
+    both = Scene(groups=(Group(network=net, radius=0.3), loose))
+    state = both.start(0)
+    state.pos[0, -2:] = [[0.1, 0.1], [0.65, 0.1]]
+    state.vel[0, :-2], state.vel[0, -2:] = (1, 0), ((0, 1), (0, 3))
+    found = measure(both, state)
+    assert (found["contacts"], found["polarisation"]) == (2, 1)
+    alone = both.model_copy(update={"groups": both.groups[:1]})
+    found = measure(alone, alone.start(0))
+    assert math.isnan(found["contacts"])
+    assert math.isnan(found["polarisation"])
+    assert found["nearest_neighbour"] == pytest.approx(0.2)
 
 
 def test_dead_agents_are_not_measured() -> None:

@@ -463,7 +463,8 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     instants = 1 if trajectory.last is trajectory.first else 2
     with progress_bar("measuring", instants * scene.agents, "agents", f"measuring {scene.agents:,} agents") as progress:
         measured = trajectory.measures(progress)
-    rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in measured.items()]
+    meant = {name: values for name, values in measured.items() if not all(map(math.isnan, values))}
+    rows = [(name, text(a), text(b), MEASURES[name]) for name, (a, b) in meant.items()]
     title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
     show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
     work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockenv.geometry.shapes import distance_to_shapes
 from flockenv.model.state import State
@@ -18,7 +19,7 @@ MEASURES = {
     "speed": "m/s, mean",
     "polarisation": "0 to 1: length of the mean heading",
     "nearest_neighbour": "m, mean distance of centres",
-    "contacts": "agents that overlap their nearest neighbour or an obstacle",
+    "contacts": "agents outside networks that overlap their nearest neighbour or an obstacle",
 }
 """Names and units of what `measure` returns."""
 
@@ -28,6 +29,8 @@ def measure(
 ) -> dict[str, float]:
     """Return the measures of one world by name; NaN if one has no meaning (spacing of a single agent).
 
+    Particles of networks have no polarisation, and overlap others of their network by design: they are left out of both
+    measures, which are NaN if there are no other agents.
     scene: that of the state; state: at the instant; world: index of the world.
 
     progress: called with the number of agents whose nearest neighbour has been found.
@@ -42,6 +45,7 @@ def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], N
     radius = np.asarray(scene.body.radius, np.float64)[alive]
     speed = np.linalg.norm(vel, axis=1)
     nearest, who = nearest_distances(pos, scene.space, progress)
+    loose = _outside_networks(scene)[alive]
     touching = nearest < radius + radius[who]
     for centre, size in zip(state.obstacles.centre[world], state.obstacles.radius[world], strict=True):
         touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
@@ -51,7 +55,12 @@ def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], N
     return {
         "agents": float(alive.sum()),
         "speed": float(speed.mean()) if len(speed) else np.nan,
-        "polarisation": polarisation(vel),
+        "polarisation": polarisation(vel[loose]),
         "nearest_neighbour": float(nearest.mean()) if len(pos) > 1 else np.nan,
-        "contacts": float(touching.sum()),
+        "contacts": float(touching[loose].sum()) if _outside_networks(scene).any() else np.nan,
     }
+
+
+def _outside_networks(scene: Scene) -> NDArray[np.bool_]:
+    """Return True for the agents that are no particles of a network, (N,)."""
+    return np.repeat([group.network is None for group in scene.groups], [group.size for group in scene.groups])
