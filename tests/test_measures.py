@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
-from flockenv.model.networks import Cloth
+from flockenv.model.networks import Cloth, Jelly, Mesh, Network
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
 from flockenv.studies.measures import MEASURES, measure, nearest_distances, order, polarisation
@@ -85,8 +85,12 @@ def test_measures_of_agents_placed_by_hand() -> None:
     vel = [[[3, 4], [3, 4], [3, 4], [3, 4]]]
     found = measure(scene, scene.start(0).with_motion(pos, vel))
     assert found == pytest.approx(
-        {"agents": 4, "speed": 5, "polarisation": 1, "nearest_neighbour": (0.9 + 0.9 + 7.6 + 7.6) / 4, "contacts": 3}
-    )
+        {
+            "agents": 4, "speed": 5, "polarisation": 1, "nearest_neighbour": (0.9 + 0.9 + 7.6 + 7.6) / 4, "contacts": 3,
+            "volume": math.nan, "smallest_element": math.nan,
+        },
+        nan_ok=True,
+    )  # fmt: skip
     assert found.keys() == MEASURES.keys()
 
 
@@ -105,6 +109,46 @@ def test_particles_of_networks_have_no_polarisation_and_their_overlaps_are_no_co
     assert math.isnan(found["contacts"])
     assert math.isnan(found["polarisation"])
     assert found["nearest_neighbour"] == pytest.approx(0.2)
+
+
+TETRAHEDRON = Mesh(vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), tetrahedra=((0, 1, 2, 3),))
+JELLIES = [
+    (Jelly(cells=(2, 1), sides=(2, 1), stretch=1.2, origin=(0, 0)), 4),
+    (Jelly(cells=(2, 1, 1), sides=(2, 1, 1), stretch=1.2, origin=(0, 0, 0)), 10),
+    (TETRAHEDRON.model_copy(update={"stretch": 1.2}), 1),
+]
+
+
+@pytest.mark.parametrize(("network", "elements"), JELLIES)
+def test_the_volume_of_a_jelly_is_relative_to_rest_and_signed(network: Network, elements: int) -> None:
+    """Behind a group of plain agents, on a torus, across its edge: stretched 1.2 times, pulled, and mirrored."""
+    d = len(network.points(2 if elements == 4 else 3)[0])
+    plain = Group(count=3, spawn=Spawn(low=(0,) * d, high=(1,) * d))
+    scene = Scene(dimension=d, space=Torus(size=(20,) * d), groups=(plain, Group(network=network)))
+    state = scene.start(0)
+    assert scene.view.volumes(state)[0].shape == scene.view.volumes(state)[1].shape == (elements,)
+    for pull, content in ((1.0, 1.2**d), (1.5, 1.5 * 1.2**d), (-1.0, -(1.2**d))):
+        moved = scene.space.wrap(state.pos[:, 3:] * ([pull] + [1.0] * (d - 1)) - 0.5)
+        pos = np.concatenate([state.pos[:, :3], moved], axis=1)
+        found = measure(scene, state.with_motion(pos, state.vel))
+        assert (found["volume"], found["smallest_element"]) == pytest.approx((content, content))
+
+
+def test_the_smallest_element_is_inside_out_where_a_corner_is_pushed_through() -> None:
+    """A square of two triangles, one corner of which is moved beyond the diagonal: areas 1/2 and -1/4 of 1/2 each."""
+    square = Mesh(vertices=((0, 0), (1, 0), (1, 1), (0, 1)), triangles=((0, 1, 2), (0, 2, 3)))
+    scene = Scene(groups=(Group(network=square),))
+    state = scene.start(0)
+    state.pos[0, 3] = (0.75, 0.25)  # its mirror image is at (.25, .75), half as far from the diagonal
+    found = measure(scene, state)
+    assert (found["volume"], found["smallest_element"]) == pytest.approx((0.25, -0.5))
+    state.pos[0, 3] = np.inf
+    assert not math.isfinite(measure(scene, state)["volume"])
+
+
+def test_a_cloth_in_space_has_no_volume() -> None:
+    scene = Scene(dimension=3, groups=(Group(network=Cloth(cells=(2, 2), sides=(1, 1))),))
+    assert math.isnan(measure(scene, scene.start(0))["volume"])
 
 
 def test_dead_agents_are_not_measured() -> None:

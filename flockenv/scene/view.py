@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import weakref
 from collections.abc import Sequence
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from flockenv.geometry.shapes import Shape
 from flockenv.geometry.space import Plane
 from flockenv.model.appearance import Appearance
+from flockenv.model.finite_elements import contents
 from flockenv.model.networks import EDGE
 from flockenv.model.scene_view import SceneView
 from flockenv.model.snapshot import Mark, Snapshot
@@ -107,6 +109,29 @@ class View:
                 own = (e.rest for e in self.scene.effects if isinstance(e, Springs) and e.group == k)
                 found.append(next(own, 1.0) * springs.rest[springs.role == EDGE])
         return np.concatenate(found)
+
+    def volumes(self, state: State, world: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the volume of each element of networks, and that at rest, (E,) m^3 each; areas, m^2, in 2-D.
+
+        Elements are tetrahedra, or triangles in 2-D, in the order of groups; no others have a volume. That of an
+        element which is inside out is negative.
+        """
+        elements, rest = self._solids
+        with np.errstate(over="ignore", invalid="ignore"):  # of runs that diverged
+            corners = state.pos[world][elements]
+            edges = self.scene.space.displacement(corners[:, :1], corners[:, 1:])
+            return np.asarray(np.linalg.det(edges) / math.factorial(edges.shape[2])), rest
+
+    @functools.cached_property
+    def _solids(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """The elements of networks that have a volume, (E, D + 1), and their volumes at rest, (E,)."""
+        d = self.scene.dimension
+        found, rest = [np.zeros((0, d + 1), np.int32)], [np.zeros(0)]
+        for first, group in zip(self.scene.starts, self.scene.groups, strict=False):
+            if group.network is not None and (elements := group.network.elements(d)).shape[1] == d + 1:
+                found.append(first + elements)
+                rest.append(contents(group.network.rest_points(d), elements))
+        return np.concatenate(found), np.concatenate(rest)
 
     def shown_numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
         """Return the strain or inner number of every agent that its appearance shows, (N,); None without one."""

@@ -19,7 +19,9 @@ MEASURES = {
     "speed": "m/s, mean",
     "polarisation": "0 to 1: length of the mean heading",
     "nearest_neighbour": "m, mean distance of centres",
-    "contacts": "agents outside networks that overlap their nearest neighbour or an obstacle",
+    "contacts": "agents, not of networks, that overlap their nearest neighbour or an obstacle",
+    "volume": "of networks, relative to rest; area in 2-D",
+    "smallest_element": "its volume, relative to rest; < 0: inside out",
 }
 """Names and units of what `measure` returns."""
 
@@ -58,7 +60,16 @@ def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], N
         "polarisation": polarisation(vel[loose]),
         "nearest_neighbour": float(nearest.mean()) if len(pos) > 1 else np.nan,
         "contacts": float(touching[loose].sum()) if _outside_networks(scene).any() else np.nan,
+        **_volumes(scene, state, world),
     }
+
+
+def _volumes(scene: Scene, state: State, world: int) -> dict[str, float]:
+    """Return the volume of all elements of networks and of the smallest one, relative to rest; NaN without elements."""
+    now, rest = scene.view.volumes(state, world)
+    if not len(rest):
+        return {"volume": np.nan, "smallest_element": np.nan}
+    return {"volume": float(now.sum() / rest.sum()), "smallest_element": float((now / rest).min())}
 
 
 def _outside_networks(scene: Scene) -> NDArray[np.bool_]:
