@@ -194,13 +194,14 @@ def test_run_without_out_writes_nothing(tmp_path: Path) -> None:
 
 
 def test_measures_without_a_meaning_in_a_scene_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
-    """Particles of a network are no flock, and those of a block overlap each other."""
+    """Particles of a block are no flock, and overlap each other by design."""
     dice = "groups: [{radius: 0.1, network: {kind: blocks, sides: [0.1, 0.1], centres: [[0, 0]]}}]"
     Path("dice.yaml").write_text(f"{dice}\nconstraints: [{{kind: rigid_bodies}}]\n")
     for name, shown in (("tiny", True), ("dice", False)):
         assert main(["run", f"{name}.yaml", "--duration", "0"]) == 0
         out = capsys.readouterr().out
-        assert [f"\n{measure} " in out for measure in ("agents", "polarisation", "contacts")] == [True, shown, shown]
+        assert [f"\n{measure} " in out for measure in ("agents", "polarisation", "volume")] == [True, shown, not shown]
+        assert re.search(r"^contacts +0 +0 ", out, re.MULTILINE)
 
 
 def test_duration_zero_makes_no_steps(capsys: pytest.CaptureFixture[str]) -> None:

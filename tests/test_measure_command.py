@@ -231,6 +231,18 @@ def test_a_scene_in_three_dimensions_has_order_but_no_density() -> None:
     assert "density" not in values(numbers())
 
 
+def test_particles_of_a_network_are_no_flock_and_their_overlaps_are_not_counted() -> None:
+    """A net whose particles overlap, at rest, beside two agents that move to the right and do not touch."""
+    net = "{radius: 0.3, network: {kind: cloth, cells: [2, 2], sides: [0.4, 0.4], origin: [0, 0]}}"
+    two = "{count: 2, radius: 0.3, spawn: {low: [5, 5], high: [9, 9], spacing: 2, speed: [1, 1], heading: [1, 0]}}"
+    found = survey(record(load_scene(f"groups: [{net}, {two}]\ndt: 0.05\n"), 0, 2, 1), Scope()).values
+    assert (found["polarisation"], found["overlapping"], found["collisions"]) == (1, 0, 0)
+    alone = survey(record(load_scene(f"groups: [{net}]\ndt: 0.05\n"), 0, 2, 1), Scope()).values
+    assert "polarisation" not in alone
+    assert (alone["overlap"], alone["overlapping"], alone["collisions"]) == (0, 0, 0)
+    assert alone["nearest neighbour"] == pytest.approx(0.2)
+
+
 def test_the_area_of_an_obstacle_does_not_count_for_the_density() -> None:
     """A polygon fills half of the box, so the density in the rest is doubled."""
     Path("half.yaml").write_text(

@@ -94,21 +94,24 @@ def test_measures_of_agents_placed_by_hand() -> None:
     assert found.keys() == MEASURES.keys()
 
 
-def test_particles_of_networks_have_no_polarisation_and_their_overlaps_are_no_contacts() -> None:
-    """A net of particles of radius .3 m, .2 m apart, and two agents that touch: one of them is in the net."""
-    net = Cloth(cells=(2, 2), sides=(0.4, 0.4), origin=(0, 0))
+def test_particles_of_networks_have_no_polarisation_and_do_not_touch_within_a_network() -> None:
+    """Nets of particles of radius .3 m, .2 m apart, beside two agents, and beside another net."""
+    net = Group(network=Cloth(cells=(2, 2), sides=(0.4, 0.4), origin=(0, 0)), radius=0.3)
     loose = Group(count=2, radius=0.3, spawn=Spawn(low=(0, 0), high=(1, 1)))
-    both = Scene(groups=(Group(network=net, radius=0.3), loose))
-    state = both.start(0)
-    state.pos[0, -2:] = [[0.1, 0.1], [0.65, 0.1]]
+    scene = Scene(groups=(net, loose))
+    state = scene.start(0)
+    state.pos[0, -2:] = [[-0.55, 0.0], [5.0, 5.0]]  # touches (0, 0) and (0, .2), but not (0, .4)
     state.vel[0, :-2], state.vel[0, -2:] = (1, 0), ((0, 1), (0, 3))
-    found = measure(both, state)
-    assert (found["contacts"], found["polarisation"]) == (2, 1)
-    alone = both.model_copy(update={"groups": both.groups[:1]})
-    found = measure(alone, alone.start(0))
-    assert math.isnan(found["contacts"])
+    found = measure(scene, state)
+    assert (found["contacts"], found["polarisation"]) == (3, 1)
+    pair = Scene(groups=(net, net))
+    state = pair.start(0)
+    state.pos[0, 9:, 0] += 0.95  # the right column of the first, and the left one of the second
+    found = measure(pair, state)
+    assert found["contacts"] == 6
     assert math.isnan(found["polarisation"])
-    assert found["nearest_neighbour"] == pytest.approx(0.2)
+    state.pos[0, 9:, 0] = np.nan
+    assert measure(pair, state)["contacts"] == 0
 
 
 TETRAHEDRON = Mesh(vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), tetrahedra=((0, 1, 2, 3),))

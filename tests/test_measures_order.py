@@ -238,6 +238,7 @@ def test_a_collision_is_counted_when_the_contact_begins() -> None:
     pos = np.zeros((5, 3, 2))
     pos[:, 1, 0], pos[:, 2] = gap, (50, 50)
     assert collision_rate(np.arange(5.0), pos, [0.5, 0.5, 0.5], Plane()) == pytest.approx(2 * 2 / (3 * 4))
+    assert collision_rate(np.arange(5.0), pos, [0.5, 0.5, 0.5], Plane(), body=[7, 7, 7]) == 0
     assert collision_rate(np.arange(5.0), pos[:, ::-1], [0.5] * 3, Plane()) == pytest.approx(1 / 3)
     assert np.isnan(collision_rate([0.0], pos[:1], [0.5] * 3, Plane()))  # a single instant
     alive = np.ones((5, 3), bool)

@@ -14,6 +14,7 @@ from flockenv.geometry.space import Plane
 from flockenv.physics.population import Emitter
 from flockenv.scene import Scene
 from flockenv.studies import measures as m
+from flockenv.studies.measures.instant import bodies_of, outside_networks
 from flockenv.studies.measures.polygons import contains, rectangle, valid_polygon
 from flockenv.studies.trajectory import Trajectory
 
@@ -321,15 +322,18 @@ def _is_straight(run: _Run) -> bool:
 def _order(run: _Run) -> Part:
     space, mass, reach = run.scene.space, np.asarray(run.scene.body.mass, float), run.scene.parts.reach
     rows: list[tuple[float, ...]] = []
+    loose = outside_networks(run.scene)
     for pos, vel, here in run.worlds():
         near = m.nearest_distances(pos, space)[0]
         groups = m.components(pos, reach, space) if reach > 0 and len(pos) else np.nan
         rows.append((
-            m.polarisation(vel), m.milling(pos, vel, space), m.group_momentum(vel, mass[here]), _mean(near.tolist()),
-            groups,
+            m.polarisation(vel[loose[here]]), m.milling(pos, vel, space), m.group_momentum(vel, mass[here]),
+            _mean(near.tolist()), groups,
         ))  # fmt: skip
-    names = ("polarisation", "milling", "group momentum", "nearest neighbour", *(["groups"] if reach > 0 else []))
-    return {name: _mean(column) for name, column in zip(names, zip(*rows, strict=True), strict=False)}, {}
+    names = ("polarisation", "milling", "group momentum", "nearest neighbour", "groups")
+    meant = {"polarisation": loose.any(), "groups": reach > 0}
+    columns = zip(names, zip(*rows, strict=True), strict=False)
+    return {name: _mean(column) for name, column in columns if meant.get(name, True)}, {}
 
 
 def _bodies(run: _Run) -> Part:
@@ -337,14 +341,15 @@ def _bodies(run: _Run) -> Part:
     radius, space = np.asarray(run.scene.body.radius, float), run.scene.space
     at = slice(run.first, None)
     values: dict[str, float] = {}
+    body = bodies_of(run.scene)
     if radius.any():
         if run.scene.dimension == 2:
             pos, alive = run.pos[run.instants()], run.alive[run.instants()]
-            found = m.overlap_proportion(pos, radius, space, alive)
+            found = m.overlap_proportion(pos, radius, space, alive, body)
             values |= {"overlap": found.mean, "overlapping": found.share}
-        values["collisions"] = m.collision_rate(run.time[at], run.pos[at], radius, space, run.alive[at])
-    body = run.scene.body  # without a desired speed it is max_speed
-    speed = np.asarray(np.where(body.desired_speed > 0, body.desired_speed, body.max_speed), float)
+        values["collisions"] = m.collision_rate(run.time[at], run.pos[at], radius, space, run.alive[at], body)
+    made = run.scene.body  # without a desired speed it is max_speed
+    speed = np.asarray(np.where(made.desired_speed > 0, made.desired_speed, made.max_speed), float)
     if run.scene.dimension == 2 and np.isfinite(speed).all() and _is_straight(run):
         desired = (run.direction * speed)[:, None] * run.axis
         back = m.oscillation_proportion(run.vel[at], desired, run.alive[at])

@@ -45,32 +45,39 @@ def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Fl
     return np.asarray(np.where(d >= a + b, 0.0, np.where(d <= large - small, np.pi * small**2, lens)))
 
 
-def touching_pairs(pos: Floats, radius: Floats, space: Space, margin: float = 0.0) -> tuple[NDArray[np.int64], Floats]:
+def touching_pairs(
+    pos: Floats, radius: Floats, space: Space, margin: float = 0.0, body: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], Floats]:
     """Return the pairs of discs (N, D), m, that overlap, (P, 2), the smaller index first, and their distances, (P,) m.
 
-    Radii, (N,) m, are enlarged by a share `margin`, at most .001.
+    Radii, (N,) m, are enlarged by a share `margin`, at most .001. body: (N,), pairs of the same one are left out.
     """
     if len(pos) < 2 or not radius.max() > 0:
         return np.zeros((0, 2), np.int64), np.zeros(0)
     tree = cKDTree(space.wrap(pos), boxsize=space.size if isinstance(space, Torus) else None)
     pairs = tree.query_pairs(2.001 * float(radius.max()), output_type="ndarray").astype(np.int64).reshape(-1, 2)
+    if body is not None:
+        pairs = pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
     far = np.linalg.norm(space.displacement(pos[pairs[:, 0]], pos[pairs[:, 1]]), axis=1)
     near = far < (radius[pairs[:, 0]] + radius[pairs[:, 1]]) * (1 + margin)
     return pairs[near], far[near]
 
 
-def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None) -> Proportion:
+def overlap_proportion(
+    pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None, body: ArrayLike | None = None
+) -> Proportion:
     """Return how much bodies overlap: the mean of A_ij / min(A_i, A_j) over all pairs that overlap.
 
     space: the plane, box or torus in which distances are measured.
 
-    pos (T, N, 2) m; radius (N,) m; alive (T, N). `mean` is 0 if no two agents ever overlap, 1 if one always lies in the
-    other; `share` is the share of agent-instants in a pair that overlaps.
+    pos (T, N, 2) m; radius (N,) m; alive (T, N); body (N,): agents of the same one are not compared. `mean` is 0 if no
+    two agents ever overlap, 1 if one always lies in the other; `share` is the share of agent-instants in a pair that
+    overlaps.
     Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111 (arXiv 1008.4297), there of ellipses.
     """
     total, many, seen, people = 0.0, 0, 0, 0
-    for where, size, _ in _instants(pos, radius, alive):
-        pairs, far = touching_pairs(where, size, space, -ROUNDING)
+    for where, size, who in _instants(pos, radius, alive):
+        pairs, far = touching_pairs(where, size, space, -ROUNDING, None if body is None else np.asarray(body)[who])
         a, b = size[pairs[:, 0]], size[pairs[:, 1]]
         least = np.pi * np.minimum(a, b) ** 2
         # a point inside a body overlaps it entirely
@@ -101,20 +108,23 @@ def oscillation_proportion(vel: ArrayLike, desired: ArrayLike, alive: ArrayLike 
 
 
 def collision_rate(
-    time: ArrayLike, pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None
-) -> float:
+    time: ArrayLike, pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None,
+    body: ArrayLike | None = None,
+) -> float:  # fmt: skip
     """Return the rate at which agents begin to touch, 1/s per agent: 2 (pairs that newly touch) / (N T).
 
     space: the plane, box or torus in which distances are measured.
 
-    time (T,) s; pos (T, N, D) m; radius (N,) m; alive (T, N). Pairs that touch at the first instant are not counted;
-    contacts that begin and end between two instants are missed. NaN for fewer than two instants, or no agents.
+    time (T,) s; pos (T, N, D) m; radius (N,) m; alive (T, N); body (N,): agents of the same one are not compared. Pairs
+    that touch at the first instant are not counted; contacts that begin and end between two instants are missed. NaN
+    for fewer than two instants, or no agents.
     """
     when = np.asarray(time, np.float64)
     before: set[int] | None = None
     began, lived, count = 0, 0.0, len(np.asarray(radius))
     for k, (where, size, who) in enumerate(_instants(pos, radius, alive)):
-        pairs = who[touching_pairs(where, size, space, ROUNDING)[0]]
+        own = None if body is None else np.asarray(body)[who]
+        pairs = who[touching_pairs(where, size, space, ROUNDING, own)[0]]
         now = set((pairs[:, 0] * count + pairs[:, 1]).tolist())
         if before is not None:
             began += len(now - before)
