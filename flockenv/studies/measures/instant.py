@@ -37,8 +37,7 @@ def measure(
     Particles of networks are left out of polarisation, which is NaN if there are no other agents. That they overlap
     others of their network is by design, and no contact.
 
-    scene: that of the state; state: at the instant; world: index of the world.
-
+    scene: that of the state; state: at the instant; world: index of the world;
     progress: called with the number of agents whose nearest neighbour has been found.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may also be measured
