@@ -29,10 +29,11 @@ ONLY_IN = {
     "matplotlib": ("flockenv/render", "flockenv/evaluation", "flockenv/studies", "agents", "tests"),
     "pygame": ("flockenv/render", "tests"),
     "meshio": ("flockenv/scene/mesh_file.py", "tests"),
+    "trimesh": ("flockenv/scene/mesh_repair.py", "tests"),
 }
 """Libraries that only the given files and folders may import."""
 
-INSIDE_FUNCTIONS = {"matplotlib", "meshio", "pygame"}
+INSIDE_FUNCTIONS = {"matplotlib", "meshio", "pygame", "trimesh"}
 """Packages that only functions import, because loading them is slow."""
 
 

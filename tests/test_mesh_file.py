@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ import pytest
 from scipy.spatial import Delaunay
 
 from flockenv.cli.main import main
+from flockenv.geometry.mesh_distance import distances_to_mesh
 from flockenv.model.finite_elements import contents
 from flockenv.physics.effects import Elastic, Membrane, Springs
-from flockenv.scene.mesh_file import mesh_of, read_mesh, scene_of
+from flockenv.scene.mesh_file import mesh_of, obstacle_of, read_mesh, scene_of
+from flockenv.scene.mesh_repair import repair_surface
 from flockenv.scene.yaml_io import load_scene
 
 meshio = pytest.importorskip("meshio", reason="needs the extra `mesh`: pip install 'flockenv[mesh]'")
+trimesh = pytest.importorskip("trimesh", reason="needs the extra `mesh`: pip install 'flockenv[mesh]'")
 
 CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))[:, ::-1]  # bit k of a corner is coordinate k
 SQUARES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]  # outwards
@@ -190,3 +194,72 @@ def test_a_mesh_that_a_scene_cannot_hold_is_refused_in_one_line(capsys: pytest.C
     printed = capsys.readouterr()
     line = "mesh.vtk: 20,000 vertices and 19,999 elements are too many for a scene file of 1,000,000 bytes: simplify it"
     assert line in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+
+
+# --- repair ---------------------------------------------------------------------------------------------------------
+
+SOUP = CORNERS[np.array(BOX)].reshape(-1, 3)
+"""The corners of each triangle of the cube, each its own point, as in an STL file."""
+EACH = np.arange(36).reshape(-1, 3)
+
+
+@pytest.mark.parametrize(
+    ("triangles", "report"),
+    [
+        (EACH, "28 points merged, 0 triangles left out, 0 turned, 0 added to fill holes; closed"),
+        (EACH[:, ::-1], "28 points merged, 0 triangles left out, 12 turned, 0 added to fill holes; closed"),
+        (np.concatenate([EACH[:4], EACH[4:6, ::-1], EACH[6:]]), "28 points .* 2 turned, 0 added to fill holes; closed"),
+        (EACH[1:], "28 points merged, 0 triangles left out, 0 turned, 1 added to fill holes; closed"),
+        (EACH[2:], "28 points merged, 0 triangles left out, 0 turned, 2 added to fill holes; closed"),
+        (np.concatenate([EACH, EACH[3:5], [(0, 0, 7)]]), "28 points merged, 3 triangles left out, 0 turned, 0 added"),
+    ],
+    ids=["soup", "inside_out", "two_turned", "a_triangle_less", "a_square_less", "doubled"],
+)
+def test_a_repaired_cube_is_a_cube(triangles: Any, report: str) -> None:
+    with pytest.raises(ValueError, match=r"in one place|hole|face|twice|no area"):
+        obstacle_of(SOUP, triangles, spacing=0.1)
+    mended = repair_surface(SOUP, triangles)
+    assert re.match(report, mended.report), mended.report
+    solid = obstacle_of(mended.points, mended.triangles, spacing=0.1)
+    assert len(solid.vertices) == 8 and len(solid.triangles) == 12
+    corners = mended.points[mended.triangles]
+    assert np.linalg.det(corners).sum() / 6 == pytest.approx(1)  # outwards
+    inside = solid.gap(np.array([(0.5, 0.5, 0.5), (0.5, 0.5, 1.25)]))
+    assert inside == pytest.approx([-0.5, 0.25], abs=0.01)
+
+
+def test_what_cannot_be_repaired_is_refused() -> None:
+    mended = repair_surface(SOUP, EACH[:6])
+    assert mended.report.endswith("still open")
+    with pytest.raises(ValueError, match="the surface has a hole"):
+        obstacle_of(mended.points, mended.triangles, spacing=0.1)
+    with pytest.raises(ValueError, match="no triangle has an area"):
+        repair_surface(SOUP, np.array([(0, 0, 1)]))
+
+
+def test_the_command_repairs_a_file_and_says_how(capsys: pytest.CaptureFixture[str]) -> None:
+    write(CORNERS, [("triangle", BOX[1:])], "open.obj")
+    assert main(["import-mesh", "open.obj", "--obstacle", "--spacing", "0.1"]) == 2
+    assert "the surface has a hole" in capsys.readouterr().err
+    assert main(["import-mesh", "open.obj", "--obstacle", "--spacing", "0.1", "--repair"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == (
+        "import-mesh: 0 points merged, 0 triangles left out, 0 turned, 1 added to fill holes; closed\n"
+    )
+    assert len(load_scene(printed.out).obstacles[0].triangles) == 12  # type: ignore[attr-defined]
+    assert main(["import-mesh", "open.obj", "--closed", "--repair"]) == 0
+    capsys.readouterr()
+    assert main(["import-mesh", "open.obj", "--repair"]) == 2
+    assert "--repair: is of closed surfaces" in capsys.readouterr().err
+
+
+def test_distances_to_a_mesh_are_those_of_trimesh() -> None:
+    rock = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    rng = np.random.default_rng(1)
+    points = rock.vertices * rng.uniform(0.7, 1.3, (len(rock.vertices), 1)) * (1.0, 0.6, 1.4)
+    places = rng.uniform(-2, 2, (200, 3))
+    corners = points[rock.faces]
+    nearest = [trimesh.triangles.closest_point(corners, np.tile(at, (len(corners), 1))) for at in places]
+    expected = [np.linalg.norm(each - at, axis=1).min() for each, at in zip(nearest, places, strict=True)]
+    found = distances_to_mesh(points, np.array(rock.faces, np.int64), places)
+    np.testing.assert_allclose(np.abs(found), expected, atol=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -52,17 +53,30 @@ def import_mesh(
             metavar="M", min=1e-9, help="Of the obstacle's grid of distances.", show_default="a fortieth of its extent"
         ),
     ] = None,
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair",
+            help="With --obstacle or --closed: merge points, turn triangles outwards and fill small holes, by trimesh.",
+        ),
+    ] = False,
 ) -> None:
     """Print a scene in which a mesh falls on a floor: `flockenv import-mesh bunny.obj > scene.yaml`."""
     from flockenv.scene.mesh_file import mesh_of, obstacle_of, obstacle_scene_of, read_mesh, scene_of
+    from flockenv.scene.mesh_repair import repair_surface
     from flockenv.scene.yaml_io import dump_scene
 
     if obstacle and (dimension == 2 or elements not in (None, "triangles")):
         raise ValueError("--obstacle: is a surface of triangles in 3-D; leave out --dimension and --elements")
     if spacing is not None and not obstacle:
         raise ValueError("--spacing: is of the grid of an obstacle; add --obstacle")
-    points, cells = read_mesh(Path(mesh), "triangles" if obstacle else elements)
+    if repair and not (obstacle or closed):
+        raise ValueError("--repair: is of closed surfaces, as it fills holes; add --obstacle or --closed")
+    points, cells = read_mesh(Path(mesh), "triangles" if obstacle or repair else elements)
     try:
+        if repair:
+            points, cells, report = repair_surface(points, cells)
+            print(f"import-mesh: {report}", file=sys.stderr)
         if obstacle:
             solid = obstacle_of(points, cells, spacing, scale, rotate, move, merge)
             _refuse_many(solid.vertices, solid.triangles)
