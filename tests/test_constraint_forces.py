@@ -198,6 +198,29 @@ def test_a_sheet_carries_a_ball_and_its_pins_carry_both() -> None:
     np.testing.assert_allclose(pins, (0, 0, weights(scene).sum()), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_pins_beside_pins_that_move_have_no_force_between_them(dtype: str) -> None:
+    """Of springs with a damping ratio, whose ends do not oscillate: with their own masses it is that of 1 kg or so."""
+    moves = (Move(particles=("bottom_left",), velocity=(0.3, 0, 0)),)
+    cloth = Cloth(cells=(1, 1), sides=(1, 1), pinned=("top",), moves=moves)
+    scene = Scene(
+        dimension=3, groups=(Group(network=cloth, mass=0.1),), effects=(Springs(stiffness=50.0, ratio=0.2),), dt=0.001,
+        dtype=dtype,
+    )  # fmt: skip
+    found = scene.pin_forces(scene.start(0))
+    assert len(found.agent) == 3 and np.isfinite(found.force).all()
+    assert np.abs(found.force).max() < 1.0
+
+
+def test_stiff_springs_between_pins_need_no_shorter_step() -> None:
+    """A scene with 2e8 N/m was refused: the damping ratio of springs without a mass divided by 0."""
+    cloth = Cloth(cells=(2, 1), sides=(1, 1), pinned=("left", "right", "top", "bottom"))
+    for stiffness in (1e8, 2e8, 1e12):
+        Scene(
+            dimension=3, groups=(Group(network=cloth),), effects=(Springs(stiffness=stiffness, ratio=0.1),), dt=0.01
+        )  # a warning would be an error
+
+
 # --- reading --------------------------------------------------------------------------------------------------------
 
 
@@ -218,12 +241,15 @@ def test_reading_forces_changes_no_bit_and_depends_on_one_world() -> None:
 
 
 def test_a_step_that_fails_leaves_no_read_out_behind() -> None:
-    scene = discs("earliest")
-    state = placed(scene, [(0, 0.1), (1, 0.1)], [(0, 0), (0, 0)])
-    before = list(scene.stepper._settlers(1)[0])
-    with pytest.raises(IndexError):
-        scene.collision_forces(state, 3)
-    assert scene.stepper._settlers(1)[0] == before
+    """Neither of constraints nor of the linear solver."""
+    scene = ball_on_sheet().model_copy(update={"integrator": LinearlyImplicitEuler(strain=1e-12)})
+    state = scene.start(0)
+    before, solver = list(scene.stepper._settlers(1)[0]), scene.stepper._linear_solver()
+    assert solver is not None
+    hit = state.with_motion(state.pos, state.vel + np.array([1e3, 0.0, 0.0]))  # what is not held
+    with pytest.raises(ArithmeticError, match="a strain changes"):
+        scene.collision_forces(hit)
+    assert scene.stepper._settlers(1)[0] == before and not solver.records
 
 
 def test_collisions_are_refused_without_any() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from flockenv.model.networks import Cloth, Jelly, Mesh, Network
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
 from flockenv.studies.measures import MEASURES, measure, nearest_distances, order, polarisation
+from flockenv.studies.measures.bodies import nearest_of_others
+from flockenv.studies.measures.proportions import touching_pairs
 from flockenv.studies.trajectory import whole_steps
 
 
@@ -185,3 +188,36 @@ def test_a_time_that_is_no_multiple_of_dt_is_refused_with_the_nearest_multiples(
     with pytest.raises(ValueError) as caught:  # noqa: PT011  # the whole text is compared
         whole_steps("t", seconds, 0.3)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("space", [Plane(), Torus(size=(3, 3))], ids=lambda space: space.kind)
+def test_neighbours_of_another_body_are_those_of_all_distances(space: Space) -> None:
+    rng = np.random.default_rng(4)
+    pos, radius = rng.uniform(0, 3, (60, 2)), rng.uniform(0.05, 0.6, 60)
+    body = np.repeat([0, 20, 40], 20)
+    body[40:] = np.arange(40, 60)  # two networks, and twenty agents
+    far = np.linalg.norm(space.displacement(pos[:, None], pos[None]), axis=2)
+    far[body[:, None] == body[None]] = np.inf
+    found, which = nearest_of_others(pos, space, body)
+    np.testing.assert_allclose(found, far.min(axis=1), rtol=1e-12)
+    assert (which == far.argmin(axis=1)).all()
+    pairs, apart = touching_pairs(pos, radius, space, body=body)
+    wanted = np.argwhere(np.triu(far < radius[:, None] + radius))
+    assert sorted(map(tuple, pairs.tolist())) == sorted(map(tuple, wanted.tolist())) and len(wanted) > 100
+    np.testing.assert_allclose(apart, far[tuple(pairs.T)], rtol=1e-12)
+    alone, itself = nearest_of_others(pos[:20], space, body[:20])
+    assert np.isinf(alone).all() and (itself == np.arange(20)).all()
+
+
+def test_a_large_ball_beside_a_fine_cloth_is_measured_without_pairs_of_the_cloth() -> None:
+    """10,201 particles within the ball's radius: all pairs of them would take 1.9 GB."""
+    cloth = Group(network=Cloth(cells=(100, 100), sides=(1, 1)), radius=0.005)
+    ball = Group(count=1, radius=0.5, spawn=Spawn(low=(0.5, 0.5), high=(0.5, 0.5)))
+    scene = Scene(groups=(cloth, ball))
+    state = scene.start(0)
+    tracemalloc.start()
+    found = measure(scene, state)["contacts"]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    inside = np.linalg.norm(state.pos[0, :-1] - 0.5, axis=1) < 0.505
+    assert found == inside.sum() + 1 and peak < 50e6

@@ -153,9 +153,9 @@ PURE = set(
     "collision_cost content coulomb counts death_cost direction error escape factor fear friction goal_reward haste "
     "heading hungry inertia jitter lasting level lost_cost meal need opacity opening out_reward poisson price ratio "
     "ready rest restitution school share spread start start_hunger stretch success_reward touch_cost weight "
-    "winding strain yield_strain break_strain tolerance".split()
+    "winding strain yield_strain break_strain tolerance particles".split()
 )
-"""Fields whose values are ratios, factors, directions, counts, amounts between 0 and 1, or rewards for an event."""
+"""Fields whose values are ratios, factors, directions, counts, indices, amounts from 0 to 1, or rewards of events."""
 
 VARYING = {("appearance", "over"), ("vortex", "strength"), ("vortex", "maximum"), ("source", "strength"),
            ("source", "maximum"), ("sink", "strength"), ("sink", "maximum"), ("avoid_obstacles", "strength"),

@@ -210,8 +210,9 @@ class Stepper:
         settlers, solver = self._settlers(1)[0], self._linear_solver()
         unwatched, watched = settlers[:], dict[type[Constraint], WatchedSettler]()
         for k, constraint in enumerate(self.scene.constraints):
-            if isinstance(constraint, Collisions | FaceCollisions):
-                settlers[k] = watched[type(constraint)] = WatchedSettler(settlers[k])
+            for kind in (Collisions, FaceCollisions):
+                if isinstance(constraint, kind):
+                    settlers[k] = watched[kind] = WatchedSettler(settlers[k])
         if solver is not None:
             solver.records = True
         try:
@@ -229,7 +230,8 @@ class Stepper:
         for kind in (Collisions, FaceCollisions):
             change = watched[kind].change[:, 0].T if kind in watched else np.zeros((len(mass), self.scene.dimension))
             impulses.append(own * change)
-        return CollisionForces((impulses[0] + push) / dt, impulses[1] / dt)
+        bodies, faces = (impulses[0] + push) / dt, impulses[1] / dt
+        return CollisionForces(bodies.astype(self.scene.dtype), faces.astype(self.scene.dtype))
 
     def plain_scratch(self, masses: Floats | None = None) -> Any:
         """Return scratch for `accelerate`; masses: (N,) kg instead of the scene's, for this call alone."""

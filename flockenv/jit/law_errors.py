@@ -13,6 +13,7 @@ from types import FunctionType
 from typing import Any
 
 import numba
+from numba.core import types
 from numba.core.errors import ForceLiteralArg, NumbaError, TypingError, UnsupportedBytecodeError
 
 from flockenv.jit.decorators import python_of
@@ -40,7 +41,10 @@ def explain_errors(compile_types: Callable[..., Any], plan: tuple[Any, ...]) -> 
         except ForceLiteralArg:  # numba compiles again
             raise
         except (NumbaError, UnsupportedBytecodeError) as error:
-            text = _explanation(str(error), plan)
+            try:
+                text = _explanation(str(error), plan)
+            except Exception:  # numba's error must not be lost
+                text = None
             if text is None:
                 raise
             raise LawError(text) from error
@@ -49,18 +53,21 @@ def explain_errors(compile_types: Callable[..., Any], plan: tuple[Any, ...]) -> 
 
 
 def _explanation(text: str, plan: tuple[Any, ...]) -> str | None:
-    """Return one line about the law at fault; None if the plan has no law from outside the package."""
+    """Return one line about the law at fault; None if no law from outside the package is, as far as the text tells."""
     laws = [law for law in dict.fromkeys(_laws_in(plan)) if _is_outside(python_of(law).__code__.co_filename)]
     if not laws:
         return None
-    found = {f"{id(python_of(law)):#x}>": law for law in laws}  # as numba's text has it, the innermost first
-    called = [found[at] for at in re.findall(r"0x[0-9a-f]+>", text) if at in found]
+    found, reason = {id(python_of(law)): law for law in laws}, _reason(text)
+    addresses = [int(at, 16) for at in re.findall(r"0x([0-9A-Fa-f]+)>", text)]  # the innermost first
+    called = [found[at] for at in addresses if at in found]
     if called:
         file, line = _place_in(text) or _beginning(called[0])
         at_fault = f"{file}:{line}: law {python_of(called[0]).__name__!r}"
     else:  # all were compiled, and the result of one does not fit
-        at_fault = "; ".join(map(_result, laws))
-    return f"{at_fault}: {_reason(text)}; run it once with NUMBA_DISABLE_JIT=1 for a debugger"
+        at_fault = "; ".join(_result(law) for law in laws if not _gives_numbers(law))
+    if not at_fault or not reason:
+        return None
+    return f"{at_fault}: {reason}; run it once with NUMBA_DISABLE_JIT=1 for a debugger"
 
 
 def _laws_in(part: Any) -> Iterator[Any]:
@@ -89,6 +96,14 @@ def _result(law: Any) -> str:
     unfit = "is not compiled" if hasattr(law, "py_func") else "is not marked @law"
     result = f"returns {signatures[-1].return_type}" if signatures else unfit
     return f"{file}:{line}: law {python_of(law).__name__!r} {result}"
+
+
+def _gives_numbers(law: Any) -> bool:
+    """Return True if a law was compiled, and returns a tuple of numbers, as most laws do."""
+    signatures = getattr(law, "nopython_signatures", ())
+    result = signatures[-1].return_type if signatures else None
+    parts: Any = result if isinstance(result, types.BaseTuple) else [None]
+    return all(isinstance(each, types.Number) for each in parts)
 
 
 def _place_in(text: str) -> tuple[str, int] | None:

@@ -14,7 +14,7 @@ from flockenv.geometry.space import Plane
 from flockenv.physics.population import Emitter
 from flockenv.scene import Scene
 from flockenv.studies import measures as m
-from flockenv.studies.measures.instant import bodies_of, outside_networks
+from flockenv.studies.measures.bodies import bodies_of, outside_networks
 from flockenv.studies.measures.polygons import contains, rectangle, valid_polygon
 from flockenv.studies.trajectory import Trajectory
 

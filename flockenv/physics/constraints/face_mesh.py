@@ -20,7 +20,7 @@ Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
 
 SHALLOW = 1e-9
-"""m. A face may begin this deep in an obstacle, by rounding."""
+"""A face may begin this deep in an obstacle, by rounding; as a share of the largest coordinate."""
 
 
 class FaceMesh(NamedTuple):
@@ -145,10 +145,11 @@ def check_intersections(scene: SceneView, obstacles: bool) -> None:
 
 def _refuse_faces_in_round_obstacles(scene: SceneView) -> None:
     """Raise ValueError if a face is nearer to the core of a circle, capsule or wall than the radius, at the start."""
-    faces = faces_of(scene)
+    faces, points = faces_of(scene), rest_of(scene)
+    shallow = SHALLOW * max(1.0, float(np.abs(points).max(initial=0.0)))
     for k, shape in enumerate(scene.obstacles):
-        depths = depths_in(shape, rest_of(scene), faces)
-        if depths.max(initial=0.0) > SHALLOW:
+        depths = depths_in(shape, points, faces)
+        if depths.max(initial=0.0) > shallow:
             deepest = int(depths.argmax())
             a, b, c = faces[deepest].tolist()
             raise ValueError(

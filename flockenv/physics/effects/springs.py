@@ -307,9 +307,10 @@ class Springs(Effect):
         first, network, mass = network_of(groups, self.group, dimension)
         springs = network.springs(dimension)
         stiffness, i, j = self._stiffness(springs), springs.i, springs.j
-        reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two pinned ends do not oscillate
+        light = 1 / mass[i] + 1 / mass[j]  # 1/kg; two held ends do not oscillate
+        reduced = np.divide(1.0, light, out=np.zeros_like(light), where=light > 0)
         firm = stiffness * self._slope_at_rest("right")
-        damping = self.damping + 2 * self.ratio * np.sqrt(firm * np.minimum(reduced, 1e300))
+        damping = self.damping + 2 * self.ratio * np.sqrt(firm * reduced)
         rest = self.rest * springs.rest
         kinks = [part for strain, turn in self._kinks for part in (np.full(len(rest), strain), turn * stiffness)]
         every = [stiffness * self._slope_at_rest("left"), damping, rest, *kinks, rest]

@@ -39,6 +39,8 @@ def _method_named(name: str) -> Integrator:
     values = dict[str, float]()
     for text in given:
         field, _, number = text.partition("=")
+        if field in values:
+            raise ValueError(f"methods: {printable(name)}: {printable(field)} is given twice")
         try:
             values[field] = float(number)
         except ValueError:

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flockenv.geometry.shapes import distance_to_shapes
 from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.studies.measures.order import FARTHEST, nearest_distances, polarisation
-from flockenv.studies.measures.proportions import touching_pairs
+from flockenv.studies.measures.bodies import bodies_of, nearest_of_others, outside_networks
+from flockenv.studies.measures.order import nearest_distances, polarisation
 
-__all__ = ["MEASURES", "bodies_of", "measure", "outside_networks"]
-
-Floats = NDArray[np.float64]
+__all__ = ["MEASURES", "measure"]
 
 MEASURES = {
     "agents": "alive",
     "speed": "m/s, mean",
     "polarisation": "0 to 1: length of the mean heading",
     "nearest_neighbour": "m, mean distance of centres",
-    "contacts": "agents that overlap their nearest neighbour or an obstacle; not within a network",
+    "contacts": "agents that overlap their nearest neighbour outside their network, or an obstacle",
     "volume": "of networks, relative to rest; area in 2-D",
     "smallest_element": "its volume, relative to rest; < 0: inside out",
 }
@@ -49,11 +46,10 @@ def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], N
     pos, vel = (np.asarray(a[world][alive], np.float64) for a in (state.pos, state.vel))
     radius = np.asarray(scene.body.radius, np.float64)[alive]
     speed = np.linalg.norm(vel, axis=1)
-    nearest, who = nearest_distances(pos, scene.space, progress)
-    body, loose = bodies_of(scene)[alive], outside_networks(scene)
-    touching = nearest < radius + radius[who]
-    if not loose.all():
-        touching = np.isin(np.arange(len(pos)), _pairs_of_bodies(pos, radius, scene, body))
+    nearest, which = nearest_distances(pos, scene.space, progress)
+    loose = outside_networks(scene)
+    apart, other = (nearest, which) if loose.all() else nearest_of_others(pos, scene.space, bodies_of(scene)[alive])
+    touching = apart < radius + radius[other]
     for centre, size in zip(state.obstacles.centre[world], state.obstacles.radius[world], strict=True):
         touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
     if scene.shapes:
@@ -75,23 +71,3 @@ def _volumes(scene: Scene, state: State, world: int) -> dict[str, float]:
     if not len(rest):
         return {"volume": np.nan, "smallest_element": np.nan}
     return {"volume": float(now.sum() / rest.sum()), "smallest_element": float((now / rest).min())}
-
-
-def outside_networks(scene: Scene) -> NDArray[np.bool_]:
-    """Return True for the agents that are no particles of a network, (N,)."""
-    return np.repeat([group.network is None for group in scene.groups], [group.size for group in scene.groups])
-
-
-def bodies_of(scene: Scene) -> NDArray[np.int64]:
-    """Return the number of the body of each agent, (N,): itself, or the first particle of its network."""
-    body = np.arange(scene.agents)
-    for first, group in zip(scene.starts, scene.groups, strict=False):
-        if group.network is not None:
-            body[first : first + group.size] = first
-    return body
-
-
-def _pairs_of_bodies(pos: Floats, radius: Floats, scene: Scene, body: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the pairs of agents of different bodies that overlap, (P, 2); positions that are not finite have none."""
-    here = np.flatnonzero((np.abs(pos) < FARTHEST).all(axis=1))
-    return here[touching_pairs(pos[here], radius[here], scene.space, body=body[here])[0]]

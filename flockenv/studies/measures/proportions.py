@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
-from flockenv.geometry.space import Space, Torus
+from flockenv.geometry.space import Space
+from flockenv.studies.measures.bodies import near_pairs
 
 __all__ = [
     "Proportion",
@@ -50,14 +50,11 @@ def touching_pairs(
 ) -> tuple[NDArray[np.int64], Floats]:
     """Return the pairs of discs (N, D), m, that overlap, (P, 2), the smaller index first, and their distances, (P,) m.
 
-    Radii, (N,) m, are enlarged by a share `margin`, at most .001. body: (N,), pairs of the same one are left out.
+    Radii, (N,) m, are enlarged by a share `margin`, at most 5e-4. body: (N,), pairs of the same one are left out.
     """
     if len(pos) < 2 or not radius.max() > 0:
         return np.zeros((0, 2), np.int64), np.zeros(0)
-    tree = cKDTree(space.wrap(pos), boxsize=space.size if isinstance(space, Torus) else None)
-    pairs = tree.query_pairs(2.001 * float(radius.max()), output_type="ndarray").astype(np.int64).reshape(-1, 2)
-    if body is not None:
-        pairs = pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
+    pairs = near_pairs(pos, radius, space, np.arange(len(pos)) if body is None else body, 5e-4)
     far = np.linalg.norm(space.displacement(pos[pairs[:, 0]], pos[pairs[:, 1]]), axis=1)
     near = far < (radius[pairs[:, 0]] + radius[pairs[:, 1]]) * (1 + margin)
     return pairs[near], far[near]
