@@ -60,9 +60,6 @@ WEAK = 0.1
 STEADY = "semi_implicit_euler, velocity_verlet or rk4"
 """Methods with stable steps for undamped oscillations."""
 
-EXACT = 1 + 1e-9
-"""Limits are as exact as this; a dt that differs less from one is no longer than it."""
-
 ALTERNATIVES: tuple[Integrator, ...] = (SemiImplicitEuler(), LinearlyImplicitEuler(), ImplicitEuler())
 """Methods that are recommended where another one needs tiny steps, the cheapest first."""
 
@@ -261,7 +258,7 @@ def check_dt(scene: SceneView) -> None:
     Effects that act at times, or with bounded forces, do not make it blow up: see `Effect.always`.
     """
     suggestion = suggest_dt(scene)
-    if scene.dt <= EXACT * suggestion.dt:
+    if scene.dt <= suggestion.dt:
         return
     method = scene.integrator
     always = _suggest(scene, [found for found in _effect_rates(scene, method) if found[0].always], method)
@@ -290,7 +287,7 @@ def _limit_message(scene: SceneView, suggestion: Suggestion) -> str:
 def _rounded_down(seconds: float, digits: int = 3) -> str:
     """Return a time with a few digits, not above its value: advice that is followed must not warn again."""
     nearest = f"{seconds:.{digits}g}"
-    return nearest if float(nearest) <= EXACT * seconds else f"{seconds * (1 - 0.5 * 10.0 ** (1 - digits)):.{digits}g}"
+    return nearest if float(nearest) <= seconds else f"{seconds * (1 - 0.5 * 10.0 ** (1 - digits)):.{digits}g}"
 
 
 def _stable_alternative(scene: SceneView) -> str:
