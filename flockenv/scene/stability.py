@@ -280,14 +280,14 @@ def _limit_message(scene: SceneView, suggestion: Suggestion) -> str:
         most = _rounded_down(suggestion.dt)
         limit_text = f"at most {most} s is stable, so take dt <= {most} s{_stable_alternative(scene)}"
     else:
-        limit_text = f"at most {_rounded_down(suggestion.dt, 4)} s is stable"
+        limit_text = f"at most {suggestion.dt:.4g} s is stable"
     return f"dt = {scene.dt:g} s: {kind} with {suggestion.effect} ({text}): {limit_text}"
 
 
-def _rounded_down(seconds: float, digits: int = 3) -> str:
-    """Return a time with a few digits, not above its value: advice that is followed must not warn again."""
-    nearest = f"{seconds:.{digits}g}"
-    return nearest if float(nearest) <= seconds else f"{seconds * (1 - 0.5 * 10.0 ** (1 - digits)):.{digits}g}"
+def _rounded_down(seconds: float) -> str:
+    """Return a time with three digits, not above its value: advice that is followed must not warn again."""
+    nearest = f"{seconds:.3g}"
+    return nearest if float(nearest) <= seconds else f"{seconds * 0.995:.3g}"
 
 
 def _stable_alternative(scene: SceneView) -> str:
