@@ -158,6 +158,9 @@ def test_hybrids_at_home_are_level_with_the_better_of_rules_and_ppo() -> None:
     assert len(found) == 7 and set(found.values()) == {"level"}
     better = {task for task, *_ in found if lead(at(task, "home", folder=folder), name, "ppo").low > 0}
     assert better == {"corridor", "flock"}
+    cards = [json.loads(path.read_text()) for path in sorted((ROOT / "agents/policies" / name).glob("*-seed-?.json"))]
+    unlearned = [card["task"] for card in cards if card["tuning_mean"] == card["curve"][0]["mean"]]
+    assert len(cards) == 35 and unlearned == ["corridor"] * 5 + ["school"]
     herd = at("herd", "home", folder=folder)
     assert success(herd, name).min() == 1.0 and success(herd, "ppo").min() == 0.0
 
